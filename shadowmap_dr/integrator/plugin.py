@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from ..errors import ShadowmapError
 from ..jit.gpu import keep_registers
+from ..jit.handover import derivatives_only
 from ..jit.types import Bool, Color3f, Float, TensorXf, UInt32
 from ..rendering.film.aovs import aov_names
 from ..rendering.film.film import put_into_film
@@ -86,7 +87,8 @@ class Shell:
                 replay = record.replay_backward if self.options.recorded is True else record.try_to_replay_backward
                 if replay(scene, sensor, spp or 1, gradient, SceneState.of(scene, sensor, now)):
                     return
-            image = record.render(scene, sensor, spp or 1, now)
+            with derivatives_only():
+                image = record.render(scene, sensor, spp or 1, now)
             if dr.grad_enabled(image):
                 backward(image, gradient)
 
@@ -184,7 +186,8 @@ def make_class() -> type:
             DeferredImages.forget_all()
             keep_registers()
             with dr.resume_grad():
-                image = self.shell.image(scene, sensor_of(scene, sensor), spp)
+                with derivatives_only():
+                    image = self.shell.image(scene, sensor_of(scene, sensor), spp)
                 if not dr.grad_enabled(image):
                     return dr.zeros(mi.TensorXf, image.shape)
                 # Only edges are cleared. Gradients of shared parts of the graph, such as vertex normals that Mitsuba has computed

@@ -77,10 +77,16 @@ NO_RESULTS = PackedResults.of([])
 
 
 class _State(threading.local):
-    """``kept``: results of the computation that runs, if any are kept; ``given``: those of the first, if there were any."""
+    """State of the computation that runs.
+
+    kept    its results, if any are kept
+    given   those of the first, if there were any
+    valued  False if only derivatives are asked for
+    """
 
     kept: Results | None = None
     given: Iterator[tuple[str, PyTree]] | None = None
+    valued: bool = True
 
 
 _state = _State()
@@ -110,6 +116,21 @@ def using(results: Results) -> Iterator[None]:
         _state.given = before
 
 
+@contextmanager
+def derivatives_only() -> Iterator[None]:
+    """Leave the values of the computation inside undefined where they cost time: only its derivatives are asked for."""
+    before, _state.valued = _state.valued, False
+    try:
+        yield
+    finally:
+        _state.valued = before
+
+
+def wants_values() -> bool:
+    """False within :func:`derivatives_only`."""
+    return _state.valued
+
+
 def computed(name: str, function: Callable[[], ResultT]) -> ResultT:
     """Result of a function that returns detached arrays, or the result of the first computation."""
     if _state.given is not None:
@@ -137,7 +158,7 @@ def stored(name: str, tree: TreeT, beside: PyTree = None) -> TreeT:
     Derivatives need them if the tree is attached, or arrays that it is multiplied with (``beside``). Values may be those of the
     first computation. Derivatives are those of the tree. Trees of more than four million lanes are left alone.
     """
-    if max((dr.width(array) for array in arrays_of(tree)), default=0) > _MOST_STORED:
+    if not _state.valued or max((dr.width(array) for array in arrays_of(tree)), default=0) > _MOST_STORED:
         return tree
     if _state.given is not None:
         return evaluated(name, tree)

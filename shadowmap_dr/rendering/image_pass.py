@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..jit.arrays import interleave
 from ..jit.broadcast import broadcast_differentiable
-from ..jit.handover import computed, evaluated, stored
+from ..jit.handover import computed, evaluated, stored, wants_values
 from ..jit.types import Bool, Color3f, Float, TensorXf
 from ..raster import Crossings, antialias
 from ..scene.geometry import Geometry
@@ -74,6 +74,7 @@ class ImagePass:
                 meetings=True,
                 gap=least_gap(view.sensor),
                 continued=True,
+                derivatives_only=not wants_values(),
             )
             return _picture(flat, view, len(channels), named)
         return self._mixed(color, seen.active, view, crossings, named)
@@ -261,8 +262,9 @@ class ImagePass:
         channels = self._channels(color, active, view)
         if crossings is None:
             return _picture(interleave(channels), view, len(channels), named)
-        dr.eval(channels)
-        flat = antialias(channels, view.raster, dr.detach(view.clip), view.topology, crossings=crossings)
+        flat = antialias(
+            channels, view.raster, dr.detach(view.clip), view.topology, crossings=crossings, derivatives_only=not wants_values()
+        )
         return _picture(flat, view, len(channels), named)
 
 

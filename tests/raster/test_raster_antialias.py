@@ -330,6 +330,35 @@ def test_channels_may_come_one_by_one(variant: str) -> None:
         antialias(planes[:1] + [mi.Float(1, 2, 3)], out, moved, topology)
 
 
+@pytest.mark.parametrize("separate", [False, True])
+def test_derivatives_without_values(variant: str, separate: bool) -> None:
+    """Derivatives by the values (both modes) are the same if blended values are not asked for; positions still ask for them."""
+    rng, size = np.random.default_rng(6), 20
+    world = rng.uniform(-1, 1, (45, 3)).astype(np.float32)
+    faces = np.arange(45).reshape(15, 3).astype(np.uint32)
+    topology, channels = topology_of(faces, world), rng.random((3, size * size)).astype(np.float32)
+    weights = mi.Float(rng.standard_normal(3 * size * size).astype(np.float32))
+    given: Any = {"separate": True} if separate else {}
+    results = {}
+    for attached in (False, True):
+        for only in (False, True):
+            clip = mi.TensorXf(np.c_[world, np.ones(45)].astype(np.float32))
+            number = mi.Float(0)
+            dr.enable_grad(number, *([clip] if attached else []))
+            planes = [mi.Float(c.copy()) * (1 + (k + 1) * number) for k, c in enumerate(channels)]
+            out = rasterize(clip, mi.TensorXu(faces), (size, size))
+            image = antialias(planes, out, clip, topology, derivatives_only=only, **given)
+            image = dr.ravel(mi.Color3f(*image)) if isinstance(image, list) else image
+            dr.forward(number, flags=dr.ADFlag.ClearVertices)
+            forward = dr.grad(image).numpy()
+            dr.backward(image * weights)
+            results[attached, only] = forward, dr.grad(number).numpy(), dr.grad(clip).numpy() if attached else 0, image.numpy()
+        for a, b in zip(results[attached, False][:3], results[attached, True][:3], strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+    assert np.abs(results[False, False][1]) > 0.1 and np.abs(results[True, False][2]).max() > 0.1
+    np.testing.assert_array_equal(results[True, False][3], results[True, True][3])
+
+
 def test_derivatives_of_claimed_pixels_match_differences(variant: str) -> None:
     """One pixel sees a much smaller surface: the four neighbours claim more than all of it, and share it out."""
     size, step = 8, 1e-3

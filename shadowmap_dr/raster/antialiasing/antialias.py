@@ -30,6 +30,7 @@ def antialias(
     gap: float = ...,
     folds: CoplanarCreases | None = ...,
     continued: bool = ...,
+    derivatives_only: bool = ...,
 ) -> TensorXf: ...
 
 
@@ -47,6 +48,7 @@ def antialias(
     gap: float = ...,
     folds: CoplanarCreases | None = ...,
     continued: bool = ...,
+    derivatives_only: bool = ...,
     separate: Literal[True],
 ) -> list[Float]: ...
 
@@ -65,6 +67,7 @@ def antialias(
     gap: float = ...,
     folds: CoplanarCreases | None = ...,
     continued: bool = ...,
+    derivatives_only: bool = ...,
 ) -> Float: ...
 
 
@@ -81,6 +84,7 @@ def antialias(
     gap: float = DEPTH_GAP,
     folds: CoplanarCreases | None = None,
     continued: bool = False,
+    derivatives_only: bool = False,
     separate: bool = False,
 ) -> TensorXf | Float | list[Float]:
     """Blend each pixel with the neighbours from which a silhouette separates it, by the share of the pixel they cover.
@@ -103,6 +107,7 @@ def antialias(
         folds: creases that do not count between coplanar faces, see :func:`find_crossings`.
         continued: for derivatives by the edges' positions, extrapolate values linearly from the pixels to the edge, instead of
             taking them as constant (:mod:`shadowmap_dr.raster.antialiasing.colour_jumps`).
+        derivatives_only: with a list, leave the blended values undefined if derivatives do not need them.
         separate: return a list for a list. Cheaper where the channels are not needed interleaved.
 
     Returns:
@@ -125,7 +130,9 @@ def antialias(
     flat = _checked_values(values, raster)
     positions, vertex_count = _flat_positions(positions, raster, topology)
     crease_weights = _checked_creases(creases, crease_weights, raster)
-    if isinstance(flat, list):
+    if isinstance(flat, list) and derivatives_only and not dr.grad_enabled(positions):
+        canvas = Canvas.blank_for(flat, separate)
+    elif isinstance(flat, list):
         canvas, crease_weights = Canvas.of(flat, crease_weights, separate)
     else:
         with dr.suspend_grad():

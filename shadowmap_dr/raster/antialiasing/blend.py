@@ -28,10 +28,11 @@ class Canvas:
     Attributes:
         original: the values, flat and interleaved, or a list with one array for each channel. Evaluated.
         separate: the copy has one array for each channel, too; else it is flat.
+        blank: the values are not known, and those of the copy are not asked for.
     """
 
-    def __init__(self, original: Float | list[Float], separate: bool = False) -> None:
-        self.original, self.separate = original, separate
+    def __init__(self, original: Float | list[Float], separate: bool = False, blank: bool = False) -> None:
+        self.original, self.separate, self.blank = original, separate, blank
         self._copy: Float | list[Float] | None = None
 
     @classmethod
@@ -50,13 +51,21 @@ class Canvas:
         canvas._copy = made[0] if made else None
         return canvas, beside
 
+    @classmethod
+    def blank_for(cls, values: list[Float], separate: bool) -> Canvas:
+        """Canvas of channels whose values are not asked for."""
+        return cls([dr.zeros(type(channel), dr.width(channel)) for channel in values], separate, True)
+
     @property
     def channels(self) -> list[Float] | None:
         """The values as a list, or None."""
         return self.original if isinstance(self.original, list) else None
 
     def copy(self) -> Float | list[Float]:
-        """The copy, to be written once. Evaluated."""
+        """The copy, to be written once. Evaluated unless blank."""
+        if self.blank:
+            zero = cast("list[Float]", self.original)
+            return zero if self.separate else dr.zeros(type(zero[0]), len(zero) * dr.width(zero[0]))
         if self._copy is None:
             self._copy = _copied(cast("Float", self.original))
             dr.eval(self._copy)
@@ -134,7 +143,7 @@ class _Mixer:
         self.module = backend(crossings.right)
         self.crossings, self.width, self.surroundings = crossings, width, surroundings
         self.pixels = dr.width(crossings.right)
-        self.original, self.separate = canvas.original, canvas.separate
+        self.original, self.separate, self.blank = canvas.original, canvas.separate, canvas.blank
         self.channels = dr.width(self.original) // self.pixels if canvas.channels is None else len(canvas.channels)
         # Blended values, and sums of weights, which are defined only where neighbours reach into a pixel.
         self.values, self.claims = computed("mixed values", lambda: self._mix(canvas.copy()))
@@ -153,13 +162,14 @@ class _Mixer:
                 # A pixel may take from several pairs; only the first of them writes it.
                 first = self._is_first(incoming, taker != pixel, down)
                 dr.scatter(sums, claims, taker, first)
-                self._write(result, self._mixed(taker, incoming, claims, self.read(self.original, taker)), taker, first)
+                if not self.blank:
+                    self._write(result, self._mixed(taker, incoming, claims, self.read(self.original, taker)), taker, first)
                 return weight
 
             dr.if_stmt((pixel, down, weight), weight != 0, mix, lambda *lanes: lanes[2], mode="symbolic")
 
         self.crossings.pairs.for_each(visit)
-        dr.eval(result, sums)
+        dr.eval(sums, [] if self.blank else result)
         return result, sums
 
     def _write(self, result: Float | list[Float], values: list[Float], pixel: UInt32, active: Bool) -> None:

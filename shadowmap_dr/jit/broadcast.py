@@ -35,7 +35,7 @@ LANES = 1 << 20
 LIKE_LANES = 1 << 18
 # Least number of lanes of such a block, and blocks from which on blocks become larger: threads that add to copies of their own do
 # not wait for each other.
-_FEW_LANES, _BLOCKS = 1 << 13, 32
+_FEW_LANES, _BLOCKS = 1 << 14, 32
 # Numbers of a cache line. No two copies of a table for all lanes share one.
 _LINE = 16
 # Most numbers in the copies of an array for threads.

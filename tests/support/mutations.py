@@ -65,7 +65,12 @@ def _flipped_shading(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _no_antialiasing(function: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda values, *_, **__: values
+    def unblended(values: Any, *_: Any, **__: Any) -> Any:
+        from shadowmap_dr.jit.packets import packed
+
+        return packed(values) if isinstance(values, list) else values
+
+    return unblended
 
 
 def _detached_rotation(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -80,21 +80,22 @@ def softened(lights: Sequence[Illumination], p_world: Point3f, footprints: Calla
     around, width = footprints(), dr.width(p_world)
     wide = (broadcast_differentiable(light, width) if isinstance(light, BoundedLight) else light for light in lights)
     return tuple(
-        Softened(light, _share(light, light.distances(p_world), _widths_beside(light, p_world, around)))
-        if isinstance(light, BoundedLight)
-        else light
-        for light in wide
+        Softened(light, share_inside(light, p_world, around)) if isinstance(light, BoundedLight) else light for light in wide
     )
 
 
-def share_inside(light: BoundedLight, p_world: Point3f, around: Sequence[Point3f] = ()) -> Float:
+def share_inside(light: BoundedLight, p_world: Point3f, around: Footprints | Sequence[Point3f] = ()) -> Float:
     """Share of the light (Float, N) that the outline lets through: 1 inside, 0 outside, a ramp in between. Attached.
 
     ``around``: points half way to the corners of the pixel around each of ``p_world``. The ramp is as wide as the pixel, and at
     least as wide as the rim.
     """
     distances = light.distances(p_world)
-    return _share(light, distances, _widths(light, distances, around))
+    widths = _widths_beside(light, p_world, around) if isinstance(around, Footprints) else _widths(light, distances, around)
+    share = mi.Float(1)
+    for distance, width in zip(distances, widths, strict=True):
+        share *= dr.clip(0.5 + distance / dr.maximum(width, light.falloff_width), 0, 1)
+    return share
 
 
 def _widths(light: BoundedLight, distances: list[Float], around: Sequence[Point3f]) -> list[Float]:
@@ -124,10 +125,3 @@ def _widths_beside(light: BoundedLight, p_world: Point3f, around: Footprints) ->
             return tuple(mi.Float(_NARROWEST) for _ in distances)
 
         return list(branch(beside, look, narrow, (p_world, *around.lanes), "outline of a light"))
-
-
-def _share(light: BoundedLight, distances: list[Float], widths: list[Float]) -> Float:
-    share = mi.Float(1)
-    for distance, width in zip(distances, widths, strict=True):
-        share *= dr.clip(0.5 + distance / dr.maximum(width, light.falloff_width), 0, 1)
-    return share

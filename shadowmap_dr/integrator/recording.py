@@ -11,7 +11,7 @@ import drjit as dr
 from ..jit.arrays import own_memory
 from ..jit.call_data import restored_scalars
 from ..jit.frozen import Frozen
-from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
+from ..jit.handover import NO_RESULTS, PackedResults, keeping, second_computation
 from ..jit.pytree import arrays_of, attached_places, tree_map, with_fields
 from ..jit.types import AnyArray, TensorXf
 from ..rendering.extended_lights import SoftFrusta
@@ -106,7 +106,7 @@ def _gradients(
     found = dict(zip(fields, tree_map(_fields_of(data, fields), attached), strict=True))
     renderer = renderer.with_data(with_fields(data, **found))
     with restored_scalars():
-        with using(results.unpacked()):
+        with second_computation(results):
             image = renderer.render(spp=spp)
         backward(image, gradient)
     return [dr.grad(leaf) for leaf in leaves]

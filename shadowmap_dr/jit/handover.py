@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TypeVar, cast
 
@@ -129,6 +129,11 @@ def derivatives_only() -> Iterator[None]:
 def wants_values() -> bool:
     """False within :func:`derivatives_only`."""
     return _state.valued
+
+
+def second_computation(results: PackedResults) -> AbstractContextManager[None]:
+    """Context of a second computation that is asked for derivatives: :func:`using` the results of the first, if there are any."""
+    return using(results.unpacked()) if results else derivatives_only()
 
 
 def computed(name: str, function: Callable[[], ResultT]) -> ResultT:

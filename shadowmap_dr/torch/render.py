@@ -18,7 +18,7 @@ import torch
 from ..errors import ShadowmapError, check_variant
 from ..jit.call_data import restored_scalars
 from ..jit.frozen import Frozen
-from ..jit.handover import NO_RESULTS, PackedResults, keeping, using
+from ..jit.handover import NO_RESULTS, PackedResults, derivatives_only, keeping, second_computation
 from ..jit.pytree import tree_map, with_fields
 from ..jit.types import TensorXf
 from ..rendering.extended_lights import SkyWatch, SoftFrusta, still_aimed
@@ -319,7 +319,8 @@ class _Rendering:
         with dr.resume_grad():
             arrays = attached(arrays, [tangent is not None for tangent in tangents])
             with self._scene(arrays) as renderer:
-                image = _image(self.places, *self.camera, arrays, renderer)
+                with derivatives_only():
+                    image = _image(self.places, *self.camera, arrays, renderer)
                 return forward_derivatives(arrays, (image,), tangents)
 
     def again(self) -> _Rendering:
@@ -424,7 +425,7 @@ def _backward(
         if want:
             dr.enable_grad(array)
     with restored_scalars():
-        with using(results.unpacked()):
+        with second_computation(results):
             image = _image(places, sensor, spp, arrays, renderer)
         return gradients(arrays, (image,), (adjoint,))
 

@@ -57,10 +57,14 @@ def copies_for_threads(array: Float) -> dr.ReduceMode:
     return dr.ReduceMode.Auto
 
 
-def one_buffer(columns: Sequence[Float]) -> Float:
-    """The numbers of ``Float`` arrays one after the other. Attached; each receives its gradient as a part of a buffer."""
-    # The zero at the end makes this a copy even for a single column.
-    return dr.concat([*columns, dr.zeros(type(columns[0]), 1)])
+def one_buffer(columns: Sequence[Float], multiple: int = 1) -> Float:
+    """The numbers of ``Float`` arrays one after the other, then zeros, up to a ``multiple``.
+
+    Attached; each array receives its gradient as a part of a buffer.
+    """
+    # At least one zero makes this a copy even for a single column.
+    zeros = 1 + (-sum(dr.width(column) for column in columns) - 1) % multiple
+    return dr.concat([*columns, dr.zeros(type(columns[0]), zeros)])
 
 
 def from_one_buffer(columns: Sequence[Float]) -> list[Float]:
@@ -159,7 +163,7 @@ def broadcast_differentiable(record: PyTree, width: int) -> PyTree:
     tree_map(record, lambda array: _map_numbers(array, collect))
     if not leaves or width == 1:
         return record
-    flat, block = dr.concat([*leaves, dr.zeros(type(leaves[0]), 1 + (-len(leaves) - 1) % _LINE)]), like_lanes(width)
+    flat, block = one_buffer(leaves, _LINE), like_lanes(width)
     numbers = dr.width(flat)
     (flat,), copies = in_copies([flat], width, block)
     first = copy_of_lane(backend(flat), width, copies, block) * uint_input(backend(flat), "numbers of a copy", numbers)

@@ -91,7 +91,10 @@ def share_inside(light: BoundedLight, p_world: Point3f, around: Footprints | Seq
     least as wide as the rim.
     """
     distances = light.distances(p_world)
-    widths = _widths_beside(light, p_world, around) if isinstance(around, Footprints) else _widths(light, distances, around)
+    if isinstance(around, Footprints):
+        widths = _widths_beside(light, p_world, distances, around)
+    else:
+        widths = _widths(light, distances, around)
     share = mi.Float(1)
     for distance, width in zip(distances, widths, strict=True):
         share *= dr.clip(0.5 + distance / dr.maximum(width, light.falloff_width), 0, 1)
@@ -108,15 +111,14 @@ def _widths(light: BoundedLight, distances: list[Float], around: Sequence[Point3
         return widths
 
 
-def _widths_beside(light: BoundedLight, p_world: Point3f, around: Footprints) -> list[Float]:
+def _widths_beside(light: BoundedLight, p_world: Point3f, distances: list[Float], around: Footprints) -> list[Float]:
     """As :func:`_widths`, beside the outline. Elsewhere ramps are as narrow as can be: few pixels see the outline."""
     with dr.suspend_grad():
         p_world = dr.detach(p_world)
-        distances = [dr.detach(distance) for distance in light.distances(p_world)]
         change = around.reach * light.change(p_world)
         beside = change > _LARGE
         for distance in distances:
-            beside |= dr.abs(distance) < 0.5 * dr.maximum(light.falloff_width, _ROOM * change)
+            beside |= dr.abs(dr.detach(distance)) < 0.5 * dr.maximum(light.falloff_width, _ROOM * change)
 
         def look(p_world: Point3f, *lanes: Any) -> tuple[Float, ...]:  # Any: lanes of any type
             return tuple(_widths(light, light.distances(p_world), around.points(p_world, *lanes)))
